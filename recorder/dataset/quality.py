@@ -59,6 +59,12 @@ _APART: Final = 3.0
 _INTERVAL: Final = "seconds until the next step"
 
 
+def _range(noun: str, first: int, last: int, from_s: float, to_s: float) -> str:
+    if first == last:
+        return f"{noun} {first}, {from_s:.2f} s"
+    return f"{noun}s {first} to {last}, {from_s:.2f} to {to_s:.2f} s"
+
+
 class Place(NamedTuple):
     """Steps of an episode, both included, and their times since its beginning, seconds."""
 
@@ -70,10 +76,7 @@ class Place(NamedTuple):
 
     def __str__(self) -> str:
         """Return steps and times."""
-        if self.first == self.last:
-            return f"episode {self.episode} step {self.first}, {self.from_s:.2f} s"
-        steps = f"steps {self.first} to {self.last}, {self.from_s:.2f} to {self.to_s:.2f} s"
-        return f"episode {self.episode} {steps}"
+        return f"episode {self.episode} {_range('step', *self[1:])}"
 
 
 class TopicPlace(NamedTuple):
@@ -87,9 +90,7 @@ class TopicPlace(NamedTuple):
 
     def __str__(self) -> str:
         """Return messages and times."""
-        if self.first == self.last:
-            return f"message {self.first}, {self.from_s:.2f} s"
-        return f"messages {self.first} to {self.last}, {self.from_s:.2f} to {self.to_s:.2f} s"
+        return _range("message", *self[1:])
 
 
 class Plot(NamedTuple):

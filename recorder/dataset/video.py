@@ -25,7 +25,7 @@ from typing import Any, Final, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from mcaprl.errors import LogError, UsageError, import_extra
+from mcaprl.errors import LogError, MissingExtraError, UsageError, import_extra
 from mcaprl.limits import MAX_IMAGE_PIXELS
 
 NO_KEYFRAME: Final = "there is no keyframe before it"
@@ -300,6 +300,7 @@ class _Codec(NamedTuple):
         in_mp4: Name of the codec in the MP4 files of LeRobot; empty if they do not have it.
         is_numbered: Whether packets show the numbers of their frames.
         has_parameters: Whether a keyframe needs parameter sets.
+        least_pyav: Oldest version of PyAV whose decoder reports a frame with missing references.
     """
 
     names: str
@@ -309,12 +310,20 @@ class _Codec(NamedTuple):
     is_numbered: bool = False
     has_parameters: bool = True
     options: tuple[tuple[str, str], ...] = ()
+    least_pyav: int = 0
 
 
 _CODECS: Final = {
     "h264": _Codec(r"h\.?264|avc", "h264", _h264, "h264", is_numbered=True),
     # Only with `explode`, a frame whose references are missing is an error.
-    "h265": _Codec(r"h\.?265|hevc", "hevc", _h265, "hevc", options=(("err_detect", "explode"),)),
+    "h265": _Codec(
+        r"h\.?265|hevc",
+        "hevc",
+        _h265,
+        "hevc",
+        options=(("err_detect", "explode"),),
+        least_pyav=16,
+    ),
     "vp9": _Codec("vp9", "vp9", _vp9, has_parameters=False),
     "av1": _Codec("av1", "libdav1d", _av1, "av1", is_numbered=True),
 }
@@ -353,6 +362,11 @@ def is_parameter_set(kind: str, unit: bytes) -> bool:
 
 Decoded = tuple[int, Any]
 """Row of a message, and its frame (`av.VideoFrame`), or a text that says why it has none."""
+
+
+def pyav_version() -> int:
+    """Return the major version of PyAV, because what it can do differs."""
+    return int(import_extra("av", "video").__version__.split(".")[0])
 
 
 class VideoDecoder:
@@ -445,6 +459,12 @@ class VideoDecoder:
 
     def _open(self, codec: _Codec) -> None:
         if codec is not self._codec:
+            if pyav_version() < codec.least_pyav:
+                raise MissingExtraError(
+                    f"PyAV {self._av.__version__} does not report which frames of {codec.decoder} a"
+                    f" lost packet damages; version {codec.least_pyav} does: pip install -U"
+                    " 'mcaprl[video]'"
+                )
             self._context = self._av.CodecContext.create(codec.decoder, "r")
             self._context.thread_count = 1
             self._context.options = {**dict(codec.options), "max_pixels": str(MAX_IMAGE_PIXELS)}

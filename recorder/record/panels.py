@@ -20,7 +20,7 @@ from mcaprl.recorder.format.metadata import LogMetadata
 from mcaprl.recorder.format.spaces import action_leaf, observation_leaves, part_names
 
 MAX_SERIES = 24  # Maximum number of series in a plot; further series are left out
-_GROUP = 6  # Series in one of several plots of an observation: more lines cannot be told apart
+_GROUP = 6  # Series in one of several plots of an observation: few enough to distinguish
 STEPS = "/rl/step{final==false}"
 EPISODE_VARIABLE = "episode"
 """Variable of a layout with the number of the episode that the viewer's user chooses."""

@@ -23,7 +23,7 @@ from mcaprl.errors import LogError, import_extra
 from mcaprl.limits import MAX_IMAGE_PIXELS
 from mcaprl.recorder.dataset.arrays import exactly
 from mcaprl.recorder.dataset.images import decoded_file
-from mcaprl.recorder.dataset.video import VideoDecoder, is_keyframe
+from mcaprl.recorder.dataset.video import VideoDecoder, is_keyframe, pyav_version
 from mcaprl.recorder.format.behavior import FIELDS
 from mcaprl.recorder.format.spaces import MIN_IMAGE_EDGE, Leaf, check_elements
 
@@ -272,8 +272,8 @@ _CODEC, _QUALITY, _KEY_FRAMES = "libx264", 18, 2
 
 
 def can_mux() -> bool:
-    """Return whether PyAV writes packets that it did not encode."""
-    return hasattr(import_extra("av", "video").container.OutputContainer, "add_mux_stream")
+    """Return whether PyAV writes packets that it did not encode; version 17 needs a stream."""
+    return pyav_version() >= 18
 
 
 class VideoWriter:

@@ -137,6 +137,15 @@ def test_packets_of_a_bag_are_copied(tmp_path: Path, name: str) -> None:
     )
 
 
+def test_old_versions_of_pyav_write_images(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    data = opened(bag_of(tmp_path / "bag.mcap", "h264", breaks=[GROUP - 1]))
+    monkeypatch.setattr(av, "__version__", "17.0.1")
+    said = data.to_lerobot(tmp_path / "out")
+    assert said[0] == (
+        "video: observation.images.camera is written as images, because PyAV is older than 18"
+    )
+
+
 def test_lerobot_reads_and_joins_copied_packets(tmp_path: Path) -> None:
     cameras = [Channel(f"/{name}", _TYPE, TEXT, images_sent(name)) for name in NAMES]
     modes = integers("/mode", [(k / RATE_HZ, 2 if k == GROUP - 1 else k % 2) for k in range(40)])

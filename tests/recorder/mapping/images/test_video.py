@@ -7,6 +7,7 @@ import sys
 from pathlib import Path
 from typing import Any
 
+import av
 import foxglove
 import numpy as np
 import pytest
@@ -14,7 +15,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 import mcaprl
-from mcaprl.errors import LogError, UsageError
+from mcaprl.errors import LogError, MissingExtraError, UsageError
 from mcaprl.limits import MAX_IMAGE_PIXELS
 from mcaprl.recorder.dataset.video import (
     LOST,
@@ -87,6 +88,15 @@ def test_with_lost_packets_a_frame_is_right_or_missing(
         for k in wanted:
             is_missing = rows[k] > first.get(rows[k] // GROUP, 40)
             assert (k in reader.failures) == is_missing
+
+
+def test_old_versions_that_do_not_report_missing_references_are_refused(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    monkeypatch.setattr(av, "__version__", "15.1.0")
+    with pytest.raises(MissingExtraError, match=r"PyAV 15\.1\.0 .* of hevc .*mcaprl\[video\]"):
+        reader_of(video_bag("h265")).read(np.arange(4))
+    assert reader_of(video_bag("h264")).read(np.arange(4)) is not None
 
 
 @pytest.mark.parametrize("name", ["h264", "h265", "vp9", "av1"])
